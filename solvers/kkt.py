@@ -44,7 +44,7 @@ from unifg.solution.status import Status
 from unifg.solvers.active_set import ActiveSet
 from unifg.solvers.augmented_objective import DIAGONAL_FLOOR
 from unifg.solvers.globalize.damping import LARGEST, Damping, gain
-from unifg.solvers.globalize.feasibility_restoration import leave, settle
+from unifg.solvers.globalize.feasibility_restoration import leave, resume, settle
 from unifg.solvers.globalize.line_search import search
 from unifg.solvers.globalize.merit import OnePrice
 from unifg.solvers.globalize.norms import largest, norm
@@ -133,7 +133,10 @@ class KKT(Solver):
             if taken is None:
                 failures += 1
                 if failures > FAILURES:
-                    return settle(run, Status.SINGULAR if found is None else Status.STALLED)
+                    if (ending := _anew(run, workspace, found is None)) is not None:
+                        return ending
+                    merit, damping, slackness, failures = OnePrice(run.program), 0.0, 0.0, 0
+                    continue
                 damping = max(RETRY_GROWTH * damping, FIRST_DAMPING)
                 if found is None:
                     slackness = max(RETRY_GROWTH * slackness, FIRST_SLACKNESS)
@@ -153,7 +156,9 @@ class KKT(Solver):
             failures = 0
             damping = _next_damping(damping, length)
             if damping > LARGEST_DAMPING:  # steps no longer move anything
-                return settle(run, Status.STALLED)
+                if (ending := _anew(run, workspace, singular=False)) is not None:
+                    return ending
+                merit, damping = OnePrice(run.program), 0.0
             slackness = 0.1 * slackness if slackness > SMALLEST_DAMPING else 0.0
         return None
 
@@ -185,12 +190,18 @@ class KKT(Solver):
                 damping.reject()
                 rejected += 1
                 if damping.value > LARGEST:
-                    return settle(run, Status.SINGULAR if found is None else Status.STALLED)
+                    if (ending := _anew(run, workspace, found is None)) is not None:
+                        return ending
+                    merit, damping, slackness, rejected = OnePrice(run.program), Damping(FIRST_LEVENBERG), 0.0, 0
+                    continue
                 if run.infeasible_stationary() and (ending := leave(run)) is not None:
                     return ending
                 continue
             if slackness and predicted <= slack:  # rows that contradict each other, met by halves as well as may be
-                return settle(run, Status.STALLED)
+                if (ending := _anew(run, workspace, singular=False)) is not None:
+                    return ending
+                merit, damping, slackness, rejected = OnePrice(run.program), Damping(FIRST_LEVENBERG), 0.0, 0
+                continue
             step, change = found
             details = {"damping": damping.value, "rejected": rejected, "multiplier_step": norm(change)}
             run.accept(reached, run.multipliers + change, norm(step), 1.0, **details)
@@ -330,6 +341,14 @@ class Newton:
     def _structure(self, program: CompiledProblem) -> None:
         self.system = program.systems.kkt(program.equality | program.inequalities)
         self._data, self._near = np.zeros(self.system.pattern.nnz), NOTHING
+
+
+def _anew(run: SolveState, workspace: Newton, singular: bool) -> Status | None:
+    """Begin anew where feasibility restoration ends, or return the reason to stop."""
+    ending = resume(run, Status.SINGULAR if singular else Status.STALLED)
+    if ending is None:
+        workspace.begin(run)
+    return ending
 
 
 def _next_damping(damping: float, length: float) -> float:

@@ -21,7 +21,7 @@ from unifg.solution.status import Status
 from unifg.solvers.augmented_objective import Primal
 from unifg.solvers.augmented_step import damped_step, model_step
 from unifg.solvers.globalize.damping import Damping
-from unifg.solvers.globalize.feasibility_restoration import settle
+from unifg.solvers.globalize.feasibility_restoration import resume, settle
 from unifg.solvers.globalize.norms import norm
 from unifg.typing import Array
 
@@ -88,7 +88,12 @@ class Penalty(Solver):
                     return Status.STALLED
                 continue
             if rho >= last:
-                return settle(run, Status.STALLED if stalled else Status.STOP_RULE)
+                if not stalled:
+                    return settle(run, Status.STOP_RULE)
+                if (ending := resume(run, Status.STALLED)) is not None:
+                    return ending
+                held, rho = workspace.prices(run.lin), self.penalty
+                continue
             rho = min(rho * self.penalty_growth, last)
 
     def _minimize(self, run: SolveState, primal: Primal, held: Array, rho: float) -> bool:

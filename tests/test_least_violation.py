@@ -83,12 +83,12 @@ def test_bounds_are_kept_and_the_squares_of_the_rest_are_least(name: str, case: 
         np.testing.assert_allclose(np.abs(solution[graph.families[family]]), value, atol=1e-5)
 
 
-BEHIND = [InteriorPoint(), SQP(), SQP(hessian="exact"), AugmentedLagrangian()]
+BEHIND = ["ipm", "sqp", "sqp exact", "alm", "kkt", "kkt lm", "penalty"]
 
 
-@pytest.mark.parametrize("solver", BEHIND, ids=["ipm", "sqp", "sqp-exact", "alm"])
+@pytest.mark.parametrize("name", BEHIND)
 @pytest.mark.parametrize("count", [15, 20, 25])
-def test_a_hard_goal_past_a_disc_dead_ahead_is_reached(solver: fg.Solver, count: int) -> None:
+def test_a_hard_goal_past_a_disc_dead_ahead_is_reached(name: str, count: int) -> None:
     """Steps all go through the disc by symmetry, to a saddle of the violation, which is none of its minima."""
     graph, x, u = graph_of(("x", fg.SE2, count + 1), ("u", fg.Rn(2), count))
     graph.fix(x[0], [0.0, 0.0, 0.0])
@@ -100,7 +100,7 @@ def test_a_hard_goal_past_a_disc_dead_ahead_is_reached(solver: fg.Solver, count:
     )
     graph.bound(u, lower=[-1.5, -3.0], upper=[1.5, 3.0])
     straight = np.linspace([0.0, 0.0, 0.0], [3.0, 0.0, 0.0], count + 1)
-    solution = solver.solve(graph, {x: straight, u: np.tile([0.75, 0.0], (count, 1))}, check=True)
+    solution = BACKENDS[name].solve(graph, {x: straight, u: np.tile([0.75, 0.0], (count, 1))}, check=True)
     assert np.abs(solution[x][:, 1]).max() > 0.3  # round it, on one side
 
 
