@@ -236,7 +236,8 @@ class SQP(Solver):
 
     def _accuracy(self, run: SolveState, workspace: Subproblems) -> float:
         """Accuracy to ask of the QP."""
-        return useful_accuracy(workspace.exact, _size(run, workspace), self.tolerance, workspace.scaling.smallest)
+        smallest = workspace.scaling.smallest * min(1.0, run.optimality.slope)
+        return useful_accuracy(workspace.exact, _size(run, workspace), self.tolerance, smallest)
 
 
 def _budget(watch: RestorationTrigger, rows: int) -> int:
@@ -270,7 +271,7 @@ def _size(run: SolveState, workspace: Subproblems) -> float:
     return max(
         largest(scaling.columns * gradient),
         largest(scaling.rows * program.violation(run.lin.constraints)),
-        measured.complementarity,
+        min(1.0, measured.slope) * measured.complementarity,
     )
 
 

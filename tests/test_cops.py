@@ -209,3 +209,11 @@ def test_a_feasible_point_is_looked_for_before_equalities_become_elastic() -> No
         for restoration in taken:
             taken[restoration] += InteriorPoint(restoration=restoration).solve(*least_time(seed), check=True).iterations
     assert taken[True] < 0.5 * taken[False], taken
+
+
+@pytest.mark.parametrize("hessian", ["auto", "exact"])
+@pytest.mark.parametrize("cost", [1e-8, 1e-3, 1e3])
+def test_the_unit_of_a_time_does_not_decide_over_sqp_on_the_graph(cost: float, hessian: str) -> None:
+    solver = SQP(qp="graph", hessian=hessian)  # type: ignore[arg-type]  # one of its words
+    found = [solver.solve(*least_time(seed, cost)) for seed in range(7)]
+    assert all(solution.converged for solution in found), [solution.status for solution in found]

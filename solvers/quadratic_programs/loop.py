@@ -57,7 +57,7 @@ def loop(address: int) -> None:
     while True:
         if now.alone == 1:
             size = kkt_size(work.kkt[0], work.kkt[1], work.kkt[2], work.kkt[5])
-            now.accuracy = useful_accuracy(False, size, now.tolerance, 1.0)
+            now.accuracy = useful_accuracy(False, size, now.tolerance, min(1.0, work.kkt[5]))
             now.damping, now.stage = max(now.next_damping, now.missing), POSED
             if now.logged > 0:
                 work.log[(now.logged - 1) * (len(work.log) // LOGGED) + BEGUN] = 1.0
@@ -158,8 +158,8 @@ def _record(problem: Problem, work: Work, shown: bool) -> bool:
 
 @compiled
 def kkt_size(stationarity: float, violation: float, complementarity: float, slope: float) -> float:
-    """The largest KKT number, with the stationarity as a gradient of the Lagrangian."""
-    return max(slope * stationarity, violation, complementarity)
+    """The largest KKT number, in the unit of the costs, of which ``slope`` is a gradient that counts as one."""
+    return max(slope * stationarity, violation, min(1.0, slope) * complementarity)
 
 
 @compiled
@@ -170,7 +170,8 @@ def useful_accuracy(exact: bool, size: float, tolerance: float, smallest: float)
         exact: whether the Hessian is that of the Lagrangian.
         size: largest KKT number of the iterate, in scaled units.
         tolerance: of the KKT test.
-        smallest: factor of a scaled unit. Where one is worth many of the graph's, its test needs more digits.
+        smallest: factor of a scaled unit, or size of the costs. Where one is worth many of the graph's, or costs are
+            small, its test needs more digits.
     """
     share = min(1e-3, size) if exact else 1e-3
     return min(max(share * size, 0.1 * tolerance * smallest), 1e-4)

@@ -71,9 +71,9 @@ class PiqpRoute:
             self._hessian = qp.pattern.matrix(np.zeros(qp.pattern.nnz))
             self._split(equal)
         assert self._solver is not None
-        self._solver.settings.eps_abs = float(np.clip(0.01 * accuracy, TIGHTEST, LOOSEST))
-        entries, lower, upper, has = limited(qp)
         unit = qp.unit
+        self._solver.settings.eps_abs = float(np.clip(0.01 * accuracy / min(1.0, unit), TIGHTEST, LOOSEST))
+        entries, lower, upper, has = limited(qp)
         self._hessian.data[:] = qp.hessian / unit
         self._equalities.data[:] = entries[self._equality_entries]
         self._inequalities.data[:] = entries[self._inequality_entries]

@@ -123,8 +123,13 @@ class Parking:
         return self._run.solve({self.x: states, self.u: controls}, data=data, **options)
 
 
-def least_time(seed: int) -> tuple[fg.Graph, dict[fg.Family, Array]]:
-    """A car that is to stand at the origin in least time, from a pose at random: x, y, heading, speed, steering."""
+def least_time(seed: int, cost: float = 1.0) -> tuple[fg.Graph, dict[fg.Family, Array]]:
+    """A car that is to stand at the origin in least time, from a pose at random: x, y, heading, speed, steering.
+
+    Args:
+        seed: of the pose.
+        cost: of a second.
+    """
     count, start = 40, np.zeros(5)
     rng = np.random.default_rng(seed)
     start[:3] = rng.uniform([-6.0, 2.0, -np.pi], [6.0, 6.0, np.pi])
@@ -134,8 +139,8 @@ def least_time(seed: int) -> tuple[fg.Graph, dict[fg.Family, Array]]:
         return np.stack([speed * np.cos(x[:, 2]), speed * np.sin(x[:, 2]), turn, u[:, 0], u[:, 1]], axis=1)
 
     graph, x, u, time = graph_of(("x", fg.Rn(5), count + 1), ("u", fg.Rn(2), count), ("time", fg.Rn(1), 1))
-    graph.minimize_scalar(lambda t: t[:, 0], time)
-    graph.minimize(fg.prior, u, np.zeros(2), sigma=10.0)
+    graph.minimize_scalar(lambda t: cost * t[:, 0], time)
+    graph.minimize(fg.prior, u, np.zeros(2), sigma=10.0 * cost**-0.5)
     graph.fix(x[0], start)
     graph.constrain(
         lambda a, u, b, t: b - a - t / count * rate(0.5 * (a + b), u), x[:-1], u, x[1:], time[0], lower=0.0, upper=0.0
