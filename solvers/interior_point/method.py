@@ -234,8 +234,9 @@ class InteriorPoint(Solver):
             if now["answer"] == state.VIOLATED and not closer:  # the penalty was too low
                 now["going_on"] = 1
             elif run.has_been_feasible or closer:
-                if restarts:  # it has left the constraints again
-                    now["theta_most"] = now["theta"]
+                if restarts:  # it has left the constraints again: not farther than where it is stuck
+                    outside = run.program.violation(run.lin.constraints)
+                    now["theta_most"] = float(np.abs(outside / workspace.work.row_units).sum())
                 workspace.begin_at(run.least_violated.flat if run.has_been_feasible else found.values.flat, self)
                 restarts += 1
             else:
