@@ -84,9 +84,10 @@ LOGGED = 24  # iterates that the log holds
 
 FIRST_DAMPING = 1e-3
 DAMPING_GROWTH = 10.0
+EXACT_GROWTH = 4.0  # by more, steps are damped too much and too little in turn
 DAMPING_DECAY = 0.9  # faster forgetting cycles between overshooting and damped steps
 SECANT_DECAY = 0.3  # of curvature that was seen along an earlier step
-EXACT_DECAY = 0.1  # with the exact Hessian nothing is left to cycle about
+EXACT_DECAY = 0.5  # the exact Hessian leaves less to cycle about
 LARGEST_DAMPING = 1e12
 SMALLEST_DAMPING = 1e-9  # keeps H positive definite without showing in the step
 
@@ -435,7 +436,7 @@ def _take(problem: Problem, work: Work) -> None:
 def next_damping(exact: bool, damping: float, length: float) -> float:
     """A shortened step means curvature that H does not know: damp, and forget it slowly."""
     if length < 1.0:
-        return min(max(DAMPING_GROWTH * damping, FIRST_DAMPING), LARGEST_DAMPING)
+        return min(max((EXACT_GROWTH if exact else DAMPING_GROWTH) * damping, FIRST_DAMPING), LARGEST_DAMPING)
     return max((EXACT_DECAY if exact else DAMPING_DECAY) * damping, SMALLEST_DAMPING)
 
 
