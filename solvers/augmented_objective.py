@@ -28,6 +28,7 @@ from unifg.problem.table import TermArrays
 from unifg.typing import Array, BoolArray, IntArray
 
 DIAGONAL_FLOOR = 1e-9  # of the largest diagonal entry: damping must act on unknowns with little curvature too
+ROUNDED = 1e-28  # of the largest diagonal entry: less is the square of what rounding leaves in a column
 
 
 class Held(NamedTuple):
@@ -60,6 +61,7 @@ class Primal:
         program: the compiled graph.
         solver: factorisation of the normal equations.
         damping: what was added to the diagonal of the matrix factorised last, relative to it.
+        curvatures: (n,) what damping is relative to, the largest diagonal seen so far; empty for the present one.
         hopeful: whether the next trial is linearised at once, since it will probably be taken.
         reached: what came of that.
     """
@@ -69,6 +71,7 @@ class Primal:
         self.program = program
         self.solver = program.systems.normal()
         self.damping = 0.0
+        self.curvatures: Array = np.zeros(0)
         self.hopeful = False
         self.reached: Linearization | None = None
         self._held: tuple[object, ...] = (None,)  # nothing is that, so that the first call describes
@@ -162,6 +165,22 @@ class Primal:
             return None
         step = -self.solver.solve(gradient)
         return step if np.isfinite(step).all() else None
+
+    def remember(self, lin: Linearization, anew: bool = False) -> None:
+        """Raise :attr:`curvatures` to the diagonal of the Hessian.
+
+        An unknown that a step has taken to where the measurements hardly see it is damped as before, so that it is not
+        taken farther still (More 1978). Nothing is compared with other unknowns, which may have other units, but to
+        tell curvature from rounding.
+
+        Args:
+            lin: where.
+            anew: forget what was seen before.
+        """
+        diagonal = lin.hessian[self.program.normal.diagonal]
+        largest = diagonal.max(initial=0.0)
+        seen = np.where(diagonal > ROUNDED * largest, diagonal, DIAGONAL_FLOOR * largest + 1e-300)
+        self.curvatures = seen if anew else np.maximum(seen, self.curvatures)
 
     def trial(self, lin: Linearization, step: Array) -> tuple[Values, Evaluation | Linearization]:
         """Values after ``step`` and what they cost, with the weights of ``lin`` held."""

@@ -14,6 +14,7 @@ from __future__ import annotations
 import numpy as np
 
 from unifg.codegen.function_pointers import linked_to
+from unifg.codegen.inner import inner
 from unifg.codegen.jit import compiled
 from unifg.codegen.loops import copy_to, dot
 from unifg.elimination.fronts import factor
@@ -34,6 +35,8 @@ ROUNDING = 1e-14
 LEAST_SHARE = 0.125  # of the second derivatives, before they are left out
 WELL = 0.75  # of the predicted decrease: a step that brings less is corrected
 CORRECTIONS = 3  # at most, of one trial
+FAITHFUL = 1e-2  # error of the predicted decrease, up to which a step may go any way
+CAUTIOUS = 1e3  # damping that makes any step short enough
 HARDLY_DAMPED = 1.0  # up to which a cost that is no square is damped before its second derivatives are left out
 STRAIGHT: Array = np.zeros(0)
 
@@ -45,6 +48,7 @@ def damped_step(
     penalty: Array,
     damping: Damping,
     bend: Array = STRAIGHT,
+    reach: Array = STRAIGHT,
 ) -> tuple[Values, Array, int] | None:
     """One accepted step on the augmented objective.
 
@@ -60,6 +64,7 @@ def damped_step(
         penalty: (M,) rho of every row.
         damping: what it begins with, and what it learns.
         bend: (nnz,) second derivatives for the model; a share of them, or none, where they leave it indefinite.
+        reach: (n,) beyond which a step is damped more, unless its model is faithful; empty for no limit.
 
     Returns:
         The new values, the tangent step and the number of rejected trials; None when no damping helps.
@@ -100,7 +105,8 @@ def damped_step(
                     break
                 base, step, values, evaluation, actual = curved_base, again[0], moved, there, better
             gained = gain(actual, predicted, slack) if evaluation.finite else None
-            if gained is not None:
+            beyond = len(reach) > 0 and damping.value < CAUTIOUS and bool((np.abs(step) > reach).any())
+            if gained is not None and not (beyond and abs(gained - 1.0) > FAITHFUL):
                 damping.accept(min(gained, 1.0))
                 damping.base = base
                 return values, step, rejected
@@ -137,6 +143,8 @@ def model_step(
         derivatives leave it indefinite.
     """
     primal.damping = damping
+    if len(primal.curvatures):
+        return _damped(primal, lin, damping)
     step = np.zeros(primal.program.size)
     predicted = minimize(
         primal.address,
@@ -154,6 +162,18 @@ def model_step(
     )
     primal.solver.adopt(not np.isnan(predicted))
     return None if np.isnan(predicted) else (step, predicted)
+
+
+def _damped(primal: Primal, lin: Linearization, damping: float) -> tuple[Array, float] | None:
+    """The same of least squares alone, whose model is one linear system."""
+    gradient, diagonal = lin.gradient[primal.program.columns.free], lin.hessian[primal.program.normal.diagonal]
+    with np.errstate(divide="ignore"):
+        primal.damping = damping * float((primal.curvatures / diagonal).max(initial=1.0))  # of the unknown seen least
+    if not primal.solver.factor(lin.hessian, damping * primal.curvatures):
+        return None
+    step = -primal.solver.solve(gradient)
+    predicted = -0.5 * inner(gradient, step)
+    return (step, predicted) if np.isfinite(predicted) else None
 
 
 @linked_to(arrays)

@@ -14,6 +14,7 @@ import numpy as np
 
 from unifg.codegen.inner import inner
 from unifg.errors import BackendError, require_positive
+from unifg.factors.steps import VECTOR, parts_of
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.linearization import Linearization
 from unifg.solution.solve_state import SolveState
@@ -112,7 +113,9 @@ class LevenbergMarquardt(LeastSquares):
     Attributes:
         damping: initial damping, relative to the diagonal of the Hessian. Along a chain of poses errors add up, so the
             curvature of its long bends is 1e-8 of the diagonal and less: more damping than that takes many steps to
-            straighten them. Where more is needed, a few rejections bring it, each growing faster than the last.
+            straighten them. Where more is needed, a few rejections bring it, each growing faster than the last. So does
+            a first step beyond the numbers of its guess whose model was not faithful: squares that do not grow without
+            end would let unknowns go where nothing is seen of them, and they would stay.
     """
 
     damping: float = 1e-8
@@ -125,25 +128,44 @@ class LevenbergMarquardt(LeastSquares):
 
     def search_step(self, run: SolveState, workspace: Primal, lin: Linearization) -> Array | None:
         """The step at the initial damping."""
+        workspace.remember(lin, anew=True)
         found = model_step(workspace, lin, np.zeros(0), np.zeros(0), self.damping)
         return None if found is None else found[0]
 
     def iterate(self, run: SolveState, workspace: Primal) -> Status | None:
         """Iterate to convergence."""
         none, run.lent = np.zeros(0), workspace
-        damping = Damping(self.damping)
+        damping, reach = Damping(self.damping), _sizes(run.program, run.lin)
+        workspace.remember(run.lin, anew=True)
         while run.status is None:
             used, workspace.hopeful, workspace.reached = damping.value, True, None
-            taken = damped_step(workspace, run.lin, none, none, damping)
+            taken = damped_step(workspace, run.lin, none, none, damping, reach=reach)
             if taken is None:
                 return Status.STALLED
             values, step, rejected = taken
             # Rejected steps are the exception: the first trial is linearised at once, later ones are evaluated first.
-            lin = workspace.linearized(values)
+            lin, reach = workspace.linearized(values), none
+            workspace.remember(lin)
             run.accept(lin, none, norm(step), 1.0, damping=used, rejected=rejected)
             if run.status is None and norm(step) < self.step_tolerance:
                 return Status.STOP_RULE
         return None
+
+
+def _sizes(program: CompiledProblem, lin: Linearization) -> Array:
+    """(n,) the largest number of a family along each coordinate of a vector; infinite for zero.
+
+    Infinite for poses, too: along a chain errors add up, and a bend may have to go any way.
+    """
+    sizes = np.full(program.columns.width, np.inf)
+    for family in program.families:
+        begin, dim = program.columns.offsets[family], family.manifold.dim
+        for part, _ in parts_of(family.manifold):
+            for axis in range(part.dim if part.kind == VECTOR and part.turn < 0 else 0):
+                column = begin + part.column + axis
+                largest = np.abs(lin.values[family][:, part.start + axis]).max()
+                sizes[column : begin + dim * family.count : dim] = largest or np.inf
+    return sizes[program.columns.free]
 
 
 @dataclass(kw_only=True)

@@ -122,13 +122,13 @@ def ranges(seed: int) -> tuple[fg.Graph, dict[fg.Family, Array], int]:
 
 @pytest.mark.product(1, of="large maps")
 def test_beacons_are_found_by_ranges_alone() -> None:
-    """From the guess itself where that leads to the answer, as with seed 4, and else along the trajectory."""
+    """From the guess itself where that leads to the answer, as with seeds 1 and 4, and else along the trajectory."""
     solver, solved = LevenbergMarquardt(), []
     for seed in (1, 2, 4, 9):
         graph, guess, rows = ranges(seed)
         costs = [solver.solve(graph, start).cost for start in (guess, fg.best_guess(graph, guess))]
         solved.append([2.0 * cost < 1.5 * rows for cost in costs])
-    assert solved == [[False, True], [False, True], [True, True], [False, True]]
+    assert solved == [[True, True], [False, True], [True, True], [False, True]]
 
 
 def test_points_in_space_velocities_and_constraints() -> None:

@@ -37,7 +37,7 @@ UNSOLVED: dict[str, set[str]] = {
     "GaussNewton": {"Freudenstein and Roth", "Beale", "Jennrich and Sampson"},
     # Damping that is relative to what vanishes with the residuals makes steps ever shorter; SQP's is absolute, and ends
     # at 1e-12 of the residuals.
-    "LevenbergMarquardt": {"Jennrich and Sampson", "Powell's singular function"},
+    "LevenbergMarquardt": {"Powell's singular function"},
     "DogLeg": {"Freudenstein and Roth", "Beale", "Jennrich and Sampson"},
     "KKT": {"HS27", "Powell's singular function"},
     # A largest penalty leaves violations; and large penalties are hard least-squares problems.

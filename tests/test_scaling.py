@@ -11,7 +11,7 @@ import pytest
 import unifg as fg
 from judge import judge
 from problems.graphs import drawn_to, graph_with
-from unifg.solvers import SQP, AugmentedLagrangian, InteriorPoint, Penalty
+from unifg.solvers import SQP, AugmentedLagrangian, InteriorPoint, LevenbergMarquardt, Penalty
 from unifg.solvers.quadratic_programs.graph_route import GraphRoute
 from unifg.solvers.quadratic_programs.scaling import MODEST, Scaling
 from unifg.solvers.quadratic_programs.subproblem import qp_error, subproblem
@@ -183,3 +183,13 @@ def test_least_squares_has_no_unit_of_cost(hessian: Literal["gauss-newton", "exa
     graph.minimize(fg.between, x[:-1], x[1:], steps, information=information * np.diag([1.0, 2.0, 10.0]))
     graph.minimize(fg.between, x[7], x[0], [1.0, 0.0, 0.7], information=information * np.eye(3))
     assert SQP(hessian=hessian).solve(graph, {x: 0.5 * rng.standard_normal((8, 3))}).converged
+
+
+def test_damping_compares_no_units() -> None:
+    """A linear graph with standard deviations of 1e-6 and 1e6: curvatures differ by 1e24."""
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(1), 3)
+    graph.minimize(fg.prior, x, [[1.0], [2.0], [3e6]], sigma=[[1e-6], [1.0], [1e6]])
+    graph.minimize(lambda a, b: b - a, x[:-1], x[1:], sigma=[[1.0], [1e6]])
+    solution = LevenbergMarquardt().solve(graph, {x: np.zeros((3, 1))})
+    assert solution.converged and solution.iterations <= 2

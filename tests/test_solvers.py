@@ -185,3 +185,38 @@ def test_a_far_start_overflows_in_silence(solver: fg.Solver) -> None:
         solution = solver.solve(graph, {x: np.array([start])})
         assert isinstance(solution.status, fg.Status)
         assert all(np.isfinite(array).all() for array in solution.values.values())
+
+
+@pytest.mark.parametrize("guess", [(1.0, 1.0), (1.0, 2.0), (1.0, 0.2)])
+def test_a_damped_step_does_not_leave_the_guess_for_where_nothing_is_seen(guess: tuple[float, float]) -> None:
+    """BoxBOD of NIST's nonlinear regressions: at a large rate the curve is a constant, and its rate has no slope."""
+    t, y = np.array([1.0, 2.0, 3.0, 5.0, 7.0, 10.0]), np.array([109.0, 149.0, 149.0, 191.0, 213.0, 224.0])
+    graph = fg.Graph()
+    b = graph.variables("b", fg.Rn(2), 1)
+    graph.minimize(lambda b, t, y: (b[:, 0] * (1.0 - np.exp(-b[:, 1] * t)) - y)[:, None], b[np.zeros(6, int)], t, y)
+    solution = LevenbergMarquardt().solve(graph, {b: np.array([guess])})
+    assert solution.converged and solution.iterations < 30
+    assert 2.0 * solution.cost == pytest.approx(1168.0088766, rel=1e-9)
+
+
+def test_points_at_a_wrong_depth_come_back() -> None:
+    """Squares of pixels are finite at infinity: undamped steps take points there, and they stay."""
+    found = 0
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        points = np.column_stack([rng.uniform(-3.0, 3.0, (15, 2)), rng.uniform(4.0, 12.0, 15)])
+        places = np.column_stack([0.6 * np.arange(4), 0.1 * rng.standard_normal((4, 2))])
+        camera, point = np.repeat(np.arange(4), 15), np.tile(np.arange(15), 4)
+        seen = points[point] - places[camera]
+        pixels = 500.0 * seen[:, :2] / seen[:, 2:] + 0.5 * rng.standard_normal((60, 2))
+        graph = fg.Graph()
+        x, p = graph.variables("x", fg.Rn(3), 4), graph.variables("p", fg.Rn(3), 15)
+        graph.minimize(fg.prior, x, places, sigma=np.array([[1e-3] * 3] + [[0.1] * 3] * 3), name="places")
+        graph.minimize(
+            lambda x, p, z: 500.0 * (p - x)[:, :2] / (p - x)[:, 2:] - z, x[camera], p[point], pixels, sigma=0.5
+        )
+        depths = points * np.exp(rng.uniform(np.log(0.2), np.log(6.0), (15, 1)))
+        guess = {x: places + 0.3 * rng.standard_normal((4, 3)), p: depths}
+        solution = LevenbergMarquardt().solve(graph, guess)
+        found += solution.converged and solution.cost < 100.0
+    assert found >= 7
