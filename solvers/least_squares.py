@@ -114,7 +114,7 @@ class LevenbergMarquardt(LeastSquares):
         damping: initial damping, relative to the diagonal of the Hessian. Along a chain of poses errors add up, so the
             curvature of its long bends is 1e-8 of the diagonal and less: more damping than that takes many steps to
             straighten them. Where more is needed, a few rejections bring it, each growing faster than the last. So does
-            a first step beyond the numbers of its guess whose model was not faithful: squares that do not grow without
+            a first step beyond the spread of the guess whose model was not faithful: squares that do not grow without
             end would let unknowns go where nothing is seen of them, and they would stay.
     """
 
@@ -153,9 +153,9 @@ class LevenbergMarquardt(LeastSquares):
 
 
 def _sizes(program: CompiledProblem, lin: Linearization) -> Array:
-    """(n,) the largest number of a family along each coordinate of a vector; infinite for zero.
+    """(n,) how far apart the vectors of a family are along each coordinate, or the number of a single one.
 
-    Infinite for poses, too: along a chain errors add up, and a bend may have to go any way.
+    Infinite where that is zero, and for poses: along a chain errors add up, and a bend may have to go any way.
     """
     sizes = np.full(program.columns.width, np.inf)
     for family in program.families:
@@ -163,8 +163,9 @@ def _sizes(program: CompiledProblem, lin: Linearization) -> Array:
         for part, _ in parts_of(family.manifold):
             for axis in range(part.dim if part.kind == VECTOR and part.turn < 0 else 0):
                 column = begin + part.column + axis
-                largest = np.abs(lin.values[family][:, part.start + axis]).max()
-                sizes[column : begin + dim * family.count : dim] = largest or np.inf
+                numbers = lin.values[family][:, part.start + axis]
+                size = np.ptp(numbers) if family.count > 1 else np.abs(numbers[0])
+                sizes[column : begin + dim * family.count : dim] = size or np.inf
     return sizes[program.columns.free]
 
 

@@ -38,6 +38,18 @@ def test_the_status_between_converged_and_singular(
     assert ("few digits" in solution.report()) == (status is not fg.Status.CONVERGED)
 
 
+@pytest.mark.parametrize("apart", [5e-7, 7e-7, 9e-7])
+def test_a_hardly_determined_direction_is_found_in_spite_of_damping(apart: float) -> None:
+    """Two unknowns of which rows of nearly the same slopes are measured: of their difference few digits are known."""
+    rows = np.array([[1.0, 1.0], [1.0, 1.0 + apart], [1.0, 1.0 - apart]])
+    graph, x = graph_with(fg.Rn(2))
+    measured = rows @ [1.0, 2.0] + 1e-9 * np.array([1.0, -1.0, 2.0])
+    graph.minimize(lambda x, a, y: ((x * a).sum(axis=1) - y)[:, None], x[np.zeros(3, int)], rows, measured)
+    solution = LevenbergMarquardt().solve(graph, {x: np.array([[0.3, -0.7]])})
+    assert solution.status is fg.Status.HARDLY_DETERMINED and solution.iterations < 60
+    np.testing.assert_allclose(solution[x][0], np.linalg.lstsq(rows, measured)[0], rtol=1e-5)
+
+
 def test_the_estimate_is_that_of_a_dense_matrix_and_has_no_units() -> None:
     conditions = []
     for unit in (1e-6, 1.0, 1e4):

@@ -8,7 +8,7 @@ import numpy as np
 
 from unifg.typing import Array
 
-SMALLEST = 1e-12
+SMALLEST = 1e-13  # DAMPED times this is HARDLY: what is said to be hardly determined has been found undamped
 LARGEST = 1e12
 SHRINK = 0.1
 SUFFICIENT = 1e-4
