@@ -296,6 +296,7 @@ def test_the_budget_ends_before_a_rule_may_call() -> None:
 def test_small_rules_by_hand() -> None:
     assert kkt_size(1e-3, 1e-4, 1e-5, 4.0) == pytest.approx(4e-3)
     assert kkt_size(1e-3, 2.0, 1e-5, 1.0) == 2.0
+    assert kkt_size(0.0, 0.0, 1e-3, 1e-4) == pytest.approx(1e-7), "complementarity has the unit of small costs"
     assert useful_accuracy(False, 1e-2, 1e-6, 1.0) == pytest.approx(1e-5)
     assert useful_accuracy(True, 1e-4, 1e-6, 0.01) == pytest.approx(1e-8)
     assert useful_accuracy(False, 1e-9, 1e-6, 1.0) == pytest.approx(1e-7)
