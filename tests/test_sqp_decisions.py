@@ -161,5 +161,5 @@ def test_damping_grows_with_shortened_steps_and_fades_with_full_ones() -> None:
     fading = next_damping(False, first, 1.0)
     assert 0.05 * first < fading < first
     assert next_damping(True, first, 1.0) < fading, "or convergence would be linear"
-    assert next_damping(True, next_damping(True, first, 0.25), 1.0) > first, "or it swings between too much and too little"
+    assert next_damping(True, next_damping(True, first, 0.25), 1.0) > first, "or it swings to and fro"
     assert next_damping(True, 1e12, 0.5) == 1e12, "an elastic problem does without, however often steps are short"
