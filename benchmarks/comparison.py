@@ -23,7 +23,7 @@ Read: TypeAlias = Callable[[Row], float | None]
 
 def where(rows: Iterable[Row], **wanted: Any) -> list[Row]:
     """Rows with these values, without those that were refused."""
-    return [row for row in rows if "error" not in row and all(row[name] == value for name, value in wanted.items())]
+    return [row for row in rows if "refused" not in row and all(row[name] == value for name, value in wanted.items())]
 
 
 def grouped(rows: Iterable[Row], *names: str) -> dict[Key, list[Row]]:

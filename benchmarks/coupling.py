@@ -55,7 +55,7 @@ def render(rows: list[Row]) -> str:
             reached = ", ".join(f"{v} {sum(r['metrics']['reached'] for r in of[v])}/{len(of[v])}" for v in VARIANTS)
             parts.append(f"### {route}, {solver}, {len(of[BASE])} seeds\n\nGoal reached: {reached}.")
             parts.append(comparison(MEASURES, of, BASE))
-    refused = sum("error" in row for row in rows)
+    refused = sum("refused" in row for row in rows)
     parts.append(f"In brackets: 95 % interval of the paired difference to sequential. Episodes refused: {refused}.")
     return "\n\n".join(parts)
 

@@ -155,8 +155,8 @@ def render(rows: list[Row]) -> str:
 
 def _drive_line(row: Row) -> list[str]:
     first = [row["case"], row["solver"], str(row["seed"])]
-    if "error" in row:
-        return [*first, f"refused: {row['error']}", *["-"] * (len(MEASURED) - 1)]
+    if "refused" in row:
+        return [*first, f"refused: {row['refused']}", *["-"] * (len(MEASURED) - 1)]
     return [*first, *(read(row["metrics"]) for read in MEASURED.values())]
 
 

@@ -130,7 +130,7 @@ def row_of(measure: Callable[..., Row], workers: int, cell: Cell) -> Row:
     try:
         return {**cell, "workers": workers, **measure(**cell)}
     except UnifgError as error:
-        return {**cell, "workers": workers, "error": str(error)}
+        return {**cell, "workers": workers, "refused": str(error)}
 
 
 def recorded(

@@ -167,7 +167,7 @@ def cells(seeds: Sequence[int]) -> list[runner.Cell]:
 
 
 def told(rows: list[Row]) -> str:
-    return ", ".join(str(row.get("double", row.get("error"))) for row in rows)
+    return ", ".join(str(row.get("double", row.get("refused"))) for row in rows)
 
 
 class Threads(ThreadPoolExecutor):
@@ -424,3 +424,14 @@ def test_discs_of_the_yielding_world_stop_before_a_robot() -> None:
     for _ in range(40):
         here.step(-0.3, 0.0)
     assert here.discs()[0, 0] < 3.0, "it goes on where the robot makes way"
+
+
+def test_a_measure_of_any_name_is_no_refusal() -> None:
+    """An error in metres was taken for the reason of a refusal, and a page without rows said that all was well."""
+    flown = runner.row_of(lambda seed: {"error": 0.4 / seed}, 1, {"seed": 2})
+    assert where([flown], seed=2) == [flown] and flown["error"] == 0.2
+
+    def refuse(seed: int) -> Row:
+        raise fg.GraphError(f"no seed {seed}")
+
+    assert where([runner.row_of(refuse, 1, {"seed": 2})], seed=2) == []
