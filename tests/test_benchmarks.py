@@ -38,7 +38,7 @@ from benchmarks import (
     runner,
 )
 from benchmarks.cold import TOLERANCE
-from benchmarks.comparison import Row
+from benchmarks.comparison import Row, where
 from benchmarks.horizon_and_velocity import Flown
 from benchmarks.report import END, begin, put_results
 from benchmarks.runner import PAGES, RESULTS, Study, Timing
