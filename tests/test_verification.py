@@ -161,6 +161,20 @@ def test_a_solve_without_time_left_is_verified_after_the_next() -> None:
     assert prepared.solve(guess, data={target: np.ones((N, 1))}).converged
 
 
+def test_a_verification_that_would_take_longer_than_is_left_waits(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The functions as written may take fifty times as long as a tick."""
+    graph, x, _ = stated(lambda x: np.cosh(x), constrained=False)
+    prepared = LevenbergMarquardt(max_iterations=50).prepare(graph)
+    guess, look = {x: np.full((N, 1), 3.0)}, prepared.program.mistraced
+    prepared.solve(guess)
+    monkeypatch.setattr(prepared.program, "mistraced", lambda *given: (time.sleep(0.3), look(*given))[1])
+    assert prepared.solve(guess).checked
+    prepared.solver.time_limit = 0.25
+    assert not any(prepared.solve(guess).checked for _ in range(6))  # the fourth and the eighth would have been
+    prepared.solver.time_limit = 5.0
+    assert prepared.solve(guess).checked
+
+
 def test_where_nothing_is_traced_nothing_is_left_unchecked() -> None:
     graph, x = drawn_to([1.0])
     prepared = GaussNewton().prepare(graph)

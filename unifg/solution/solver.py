@@ -71,6 +71,7 @@ class Prepared:
         self.single = False
         self._workspace: Any = None
         self._solves, self._owed, self._of_branches, self._bound = 0, False, 0, 0
+        self._verifying = 0.0  # seconds of the last verification
         self._last: ReferenceType[Solution] | None = None
         self._begun: tuple[Array, Array, dict[Data, Array]]  # start and data of a solve in portions
         self._lock = ReentrantLock()
@@ -353,19 +354,23 @@ class Prepared:
         if not due and self._of_branches < AT_ONCE + self._solves // LATER and program.new_branches(lin.stored, False):
             due = True
             self._of_branches += 1
-        late = time.perf_counter() - began > self.solver.time_limit
+        late = time.perf_counter() - began + self._verifying > self.solver.time_limit
         self._owed = due and late and not broken  # verified after the next solve that leaves time for it
         if not due or self._owed:
             return solution
         program.new_branches(lin.stored, True)
         mistraced: dict[str, str] = {}
-        while found := program.mistraced(lin.values, slopes, self._solves):
+        while solution.finite:
+            looked = time.perf_counter()
+            found = program.mistraced(lin.values, slopes, self._solves)
+            self._verifying = time.perf_counter() - looked
+            if not found:
+                break
             mistraced |= found
             solution = self._continued(solution, program.columns.values(solution.values), began, callback)
-            if not solution.finite:
-                break
             lin = solution._lin
-            self._broken(solution)
+            if solution.finite:
+                self._broken(solution)
         solution.checked, solution.mistraced = solution.finite, mistraced
         solution.seconds = time.perf_counter() - began
         return solution
