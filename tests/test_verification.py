@@ -167,7 +167,12 @@ def test_a_verification_that_would_take_longer_than_is_left_waits(monkeypatch: p
     prepared = LevenbergMarquardt(max_iterations=50).prepare(graph)
     guess, look = {x: np.full((N, 1), 3.0)}, prepared.program.mistraced
     prepared.solve(guess)
-    monkeypatch.setattr(prepared.program, "mistraced", lambda *given: (time.sleep(0.3), look(*given))[1])
+
+    def slowly(*given: Any) -> dict[str, str]:
+        time.sleep(0.3)
+        return look(*given)
+
+    monkeypatch.setattr(prepared.program, "mistraced", slowly)
     assert prepared.solve(guess).checked
     prepared.solver.time_limit = 0.25
     assert not any(prepared.solve(guess).checked for _ in range(6))  # the fourth and the eighth would have been
