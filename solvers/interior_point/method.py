@@ -78,8 +78,9 @@ class InteriorPoint(Solver):
             the first few leave second derivatives out, which pay only where steps converge. With the rule on, a solve
             that runs out of time or iterations hands back the last iterate that kept the constraints, if one did.
         restoration: whether, where it is stuck without ever having kept the constraints, the nearest point of least
-            violation is looked for, from which to go on or to say LOCALLY_INFEASIBLE. It can take a hundred times as
-            long as an iteration; a control loop with another start or backend to ask is better off without.
+            violation is looked for, from which to go on or to say LOCALLY_INFEASIBLE; with a cost that has no
+            curvature, a cold start looks for it after a few short steps. It can take a hundred times as long as an
+            iteration; a control loop with another start or backend to ask is better off without.
     """
 
     rehearses = True
