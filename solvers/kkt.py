@@ -162,10 +162,10 @@ class KKT(Solver):
             slackness = 0.1 * slackness if slackness > SMALLEST_DAMPING else 0.0
         return None
 
-    def _damped(self, run: SolveState, workspace: Newton) -> Status | None:
-        """Levenberg and Marquardt's iteration."""
+    def _damped(self, run: SolveState, workspace: Newton, slow: bool = False) -> Status | None:
+        """Levenberg and Marquardt's iteration; ``slow``: whether second derivatives have been found to pay."""
         merit, damping = OnePrice(run.program), Damping(FIRST_LEVENBERG)
-        rejected, slackness, slow = 0, 0.0, False
+        rejected, slackness = 0, 0.0
         while run.status is None:
             lin, slow = run.lin, slow or second_derivatives_pay(run, WORTH)
             less = damping.value / (1.0 + damping.value)
@@ -190,18 +190,14 @@ class KKT(Solver):
                 damping.reject()
                 rejected += 1
                 if damping.value > LARGEST:
-                    if (ending := _anew(run, workspace, found is None)) is not None:
-                        return ending
-                    merit, damping, slackness, rejected = OnePrice(run.program), Damping(FIRST_LEVENBERG), 0.0, 0
-                    continue
+                    ending = _anew(run, workspace, found is None)
+                    return self._damped(run, workspace, slow) if ending is None else ending
                 if run.infeasible_stationary() and (ending := leave(run)) is not None:
                     return ending
                 continue
             if slackness and predicted <= slack:  # rows that contradict each other, met by halves as well as may be
-                if (ending := _anew(run, workspace, singular=False)) is not None:
-                    return ending
-                merit, damping, slackness, rejected = OnePrice(run.program), Damping(FIRST_LEVENBERG), 0.0, 0
-                continue
+                ending = _anew(run, workspace, singular=False)
+                return self._damped(run, workspace, slow) if ending is None else ending
             step, change = found
             details = {"damping": damping.value, "rejected": rejected, "multiplier_step": norm(change)}
             run.accept(reached, run.multipliers + change, norm(step), 1.0, **details)

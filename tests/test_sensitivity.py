@@ -22,7 +22,7 @@ from unifg.problem.parameters import datum
 from unifg.problem.systems import KktStructure
 from unifg.solution import sensitivity
 from unifg.solution.gains import unfixed
-from unifg.solvers import SQP, GraduatedNonConvexity, InteriorPoint, LevenbergMarquardt
+from unifg.solvers import SQP, GaussNewton, GraduatedNonConvexity, InteriorPoint, LevenbergMarquardt
 from unifg.solvers.names import TABLE, backend
 from unifg.typing import Array
 
@@ -532,12 +532,12 @@ def test_data_that_have_been_replaced_are_noticed() -> None:
     graph, x = graph_with(fg.Rn(2))
     p = graph.data("p", [1.0, 2.0])
     graph.minimize(lambda x, p: np.sinh(x - p * p), x, p)
-    run = LevenbergMarquardt(tolerance=TIGHT).prepare(graph)
+    run = GaussNewton(tolerance=TIGHT).prepare(graph)
     first, later = (run.solve({x: np.zeros((1, 2))}, data={p: value}) for value in ([1.0, 1.5], [1.2, 1.5]))
     refused(first, "have been replaced")
     np.testing.assert_allclose(later.sensitivity("x", p), np.diag([2.4, 3.0]), rtol=1e-9)
     run.solve({x: np.zeros((1, 2))}, data={p: [1.3, 1.5]})
-    np.testing.assert_allclose(later.gradient("cost", p), 0.0, atol=1e-12)  # what has been asked is known
+    np.testing.assert_array_equal(later.gradient("cost", p), 0.0)  # what has been asked is known
     again = run.solve({x: np.zeros((1, 2))}, data={p: [1.2, 1.5]})
     np.testing.assert_allclose(again.sensitivity("x", p), later.sensitivity("x", p), rtol=1e-9)
     many = LevenbergMarquardt(tolerance=TIGHT).prepare(graph)

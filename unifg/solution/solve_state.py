@@ -373,8 +373,7 @@ class SolveState:
         """Make an iterate the present one; a ``candidate`` may be returned if the solve ends without success."""
         self.lin, self._values, self.multipliers, self.optimality = lin, None, multipliers, measured
         values = lin.stored
-        if measured.violation < self._least:
-            self._least, self._least_at = measured.violation, values
+        self._note(measured.violation, values)
         if candidate and measured.finite:
             self.consider(lin.cost, lin.constraints.copy(), values, multipliers)
 
@@ -383,15 +382,21 @@ class SolveState:
     ) -> None:
         """Take note of an iterate that a solve has left behind; all as of :meth:`consider`, finite."""
         self.iterations = number
-        if violation < self._least:
-            self._least, self._least_at = violation, values
+        self._note(violation, values)
         self.consider(cost, constraints, values, multipliers)
 
     def look_at(self, lin: Linearization) -> None:
         """Take note of a point that may violate less than all iterates."""
-        violation = float(np.abs(self.program.violation(lin.constraints)).max(initial=0.0))
+        self._note(self._farthest(lin.constraints), lin.stored)
+
+    def _note(self, violation: float, values: Array | None) -> None:
+        """Keep the values of least violation, None for the start."""
         if violation < self._least:
-            self._least, self._least_at = violation, lin.stored
+            self._least, self._least_at = violation, values
+
+    def _farthest(self, constraints: Array) -> float:
+        """Largest violation of (M,) values of the constraints."""
+        return float(np.abs(self.program.violation(constraints)).max(initial=0.0))
 
     def go_on(self) -> None:
         """Go on with :meth:`accept` after :meth:`conclude`, which has told of a part of the solve only."""
@@ -464,10 +469,7 @@ class SolveState:
     def least_violated(self) -> Values:
         """Values of least violation among the start and all iterates."""
         if self.alone:  # then nobody has looked at the start
-            outside = self.program.violation(self.program.evaluate(self._start).constraints)
-            size = float(np.abs(outside).max(initial=0.0))
-            if size < self._least:
-                self._least, self._least_at = size, None
+            self._note(self._farthest(self.program.evaluate(self._start).constraints), None)
         return self._start if self._least_at is None else self.program.columns.view(self._least_at)
 
     @property
@@ -492,7 +494,7 @@ class SolveState:
 
     def violates(self, constraints: Array) -> bool:
         """Test whether (M,) values of the constraints are outside their limits."""
-        return float(np.abs(self.program.violation(constraints)).max(initial=0.0)) > self.tolerances.violation
+        return self._farthest(constraints) > self.tolerances.violation
 
     def begin_restoration_step(self) -> bool:
         """Count a step of feasibility restoration; returns whether there is no time for it."""
