@@ -217,3 +217,13 @@ def test_the_unit_of_a_time_does_not_decide_over_sqp_on_the_graph(cost: float, h
     solver = SQP(qp="graph", hessian=hessian)  # type: ignore[arg-type]  # one of its words
     found = [solver.solve(*least_time(seed, cost)) for seed in range(7)]
     assert all(solution.converged for solution in found), [solution.status for solution in found]
+
+
+def test_squares_make_equalities_elastic_at_once() -> None:
+    """A feasible point knows nothing of the cost: from there three of these drives end at more than twice the best."""
+    case = Unicycle("straight", True, 50)
+    stated = case.formulation()
+    prepared = InteriorPoint(tolerance=1e-4).prepare(stated.graph)
+    for states, controls in case.starts(20):
+        solution = prepared.solve({stated.x: states, stated.u: controls}, check=True)
+        assert solution.restoration_steps == 0 and solution.cost < 14.0

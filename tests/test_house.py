@@ -286,7 +286,7 @@ def test_wrong_imports_are_found(source: str, module: str, wrong: bool) -> None:
 # Statements (without imports and docstrings) by part and room. They go down with every change that takes something
 # away; what raises one takes as much away elsewhere, or says in CHANGELOG why not.
 BUDGETS = {
-    "unifg solvers models": 34_605, "scenarios": 13_103, "benchmarks": 4_740, "tests": 38_721,
+    "unifg solvers models": 34_605, "scenarios": 13_103, "benchmarks": 4_740, "tests": 38_728,
     "docs examples": 1_989, "unifg/factors": 4_309, "unifg/problem": 3_596, "models": 2_347,
     "unifg/elimination": 2_192, "solvers": 5_342, "unifg/solution": 3_422, "unifg/smoothing": 1_952,
     "unifg/lie": 1_399, "unifg/view": 1_526, "unifg/files": 1_370, "unifg/pose_graphs": 2_035,
@@ -296,7 +296,7 @@ BUDGETS = {
     "scenarios/logs": 654, "scenarios/perception": 948, "scenarios/planning": 876,
 }  # fmt: skip
 # Nodes of syntax a statement: budgets are not met by denser code.
-DENSITY = {"unifg solvers models": 34_605.0, "scenarios": 13_103.6, "benchmarks": 11.9, "tests": 38_721.3}
+DENSITY = {"unifg solvers models": 34_605.0, "scenarios": 13_103.6, "benchmarks": 11.9, "tests": 38_728.3}
 
 
 @cache
